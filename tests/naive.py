@@ -567,7 +567,9 @@ def bridged(pixel, settings, times, on, off, scales):
             bounds.append(max(bound, right[0]))
 
     def follow_beyond():  # K7: by how much more than events, and bounds, say L rises beyond white in every interval
-        risen = None  # the level to which events have led, how far above it L is, and the variance of that
+        risen = (
+            None  # the level to which events have led, how far above it L is, the variance of that, the bound
+        )
         most = ev.quantisation_variance * c2 if settings.filter.unshown_tail > 0 else 0
         for k, interval in enumerate(intervals[1:-1], 1):
             a, b, left, right, *_, gain, _ = interval
@@ -581,16 +583,17 @@ def bridged(pixel, settings, times, on, off, scales):
                 beyond_from[a] = mean_beyond(short, change, scale) if short > 0 else 0.0
                 at_bound = augmented(interval, b, b) + grown(k, b)
                 total = max(short, 0) + beyond_from[a]
-                risen = at_bound - max(short, 0) - beyond_from[a], total, change
+                risen = at_bound - max(short, 0) - beyond_from[a], total, change, right[0]
             elif risen is not None:
                 level, above, change = risen[0], risen[1], min(risen[2] + change, most)
                 level += told + max(right[0] - told - level - above, 0.0)
                 heard = sum(counts(a, b)) > 0
                 level, above = (level + above / 2, above / 2) if heard else (level, above)
-                after = max(right[0] + mean_beyond(right[0] - level, change, scale) - level, 0.0)
+                bound = right[0] if heard else max(right[0], risen[3])
+                after = max(bound + mean_beyond(bound - level, change, scale) - level, 0.0)
                 after = min(after, above) if heard else after
                 beyond_from[a] = after - above
-                risen = level, after, change
+                risen = level, after, change, bound
 
     last = (pixel.middles[-1], None, first, None, scale_on, scale_off, var_on, var_off, 0.0, SURE)
     intervals.append(last)

@@ -56,7 +56,7 @@ def risen(by=0.05, **given):
 
 def of_middle(beyond: Beyond):
     (place,) = np.flatnonzero(beyond.pixels == np.ravel_multi_index(MIDDLE, SHAPE))
-    return {name: float(getattr(beyond, name)[place]) for name in ("level", "unheard", "variance")}
+    return {name: float(getattr(beyond, name)[place]) for name in ("level", "unheard", "variance", "bound")}
 
 
 @pytest.mark.parametrize("short", [-0.3, 0.0, 0.05, 0.4])
@@ -127,6 +127,18 @@ def test_a_silent_pixel_may_rise_on_from_frame_to_frame():
     assert np.all(np.diff(levels) > -1e-6)
     assert levels[-1] == pytest.approx(levels[-2], abs=1e-6)
     assert of_middle(beyond)["variance"] == pytest.approx(Q0)
+
+
+def test_a_frame_that_is_exposed_for_longer_takes_nothing_back():
+    """Its white is lower; until an event comes the light is as far up as the frame before has shown."""
+    _, beyond, _ = risen(0.05)
+    lower = frame(-0.3, window())
+    lower.value[window()] = -0.2
+    _, after, changed = follow(beyond, frame(-0.05, window()), lower)
+    assert changed == pytest.approx(0.0, abs=1e-3)
+    assert of_middle(after)["bound"] == 0.0
+    _, heard, _ = follow(after, lower, lower, off=1)
+    assert of_middle(heard)["bound"] == pytest.approx(-0.2)
 
 
 def test_an_event_tells_half_of_what_was_added():

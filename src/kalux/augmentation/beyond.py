@@ -25,8 +25,8 @@ _LEAST_SCALE: Final = np.float32(1e-3)
 """Least scale of what is expected beyond white, log intensity, since it is divided by."""
 
 _TOLD: Final = np.float32(0.5)
-"""Share of an unheard rise that the next event tells: the rest of it came before the pixel's last event had been told,
-and stays (docs/equations.md, K7)."""
+"""Share of what was unheard that the next event replaces; the other half is what the last one had left untold, and
+stays (docs/equations.md, K7)."""
 
 
 class Beyond(NamedTuple):
@@ -42,16 +42,20 @@ class Beyond(NamedTuple):
         (N,) float32: how far above that it is, by the bounds.
     variance
         (N,) float32: of the change that no event has told since a frame measured the pixel, log intensity^2.
+    bound
+        (N,) float32: of L; the highest since the pixel's last event, as exposures may differ.
     """
 
     pixels: NDArray[np.int64]
     level: NDArray[np.float32]
     unheard: NDArray[np.float32]
     variance: NDArray[np.float32]
+    bound: NDArray[np.float32]
 
     def where(self, kept: NDArray[np.bool_]) -> Beyond:
         """Those of ``kept``, (N,)."""
-        return Beyond(self.pixels[kept], self.level[kept], self.unheard[kept], self.variance[kept])
+        level, unheard, variance, bound = (plane[kept] for plane in self[1:])
+        return Beyond(self.pixels[kept], level, unheard, variance, bound)
 
     def and_of(self, others: Beyond) -> Beyond:
         """These and others."""
@@ -60,13 +64,14 @@ class Beyond(NamedTuple):
             np.concatenate((self.level, others.level)),
             np.concatenate((self.unheard, others.unheard)),
             np.concatenate((self.variance, others.variance)),
+            np.concatenate((self.bound, others.bound)),
         )
 
 
 def nothing_beyond() -> Beyond:
     """No pixel is clipped that has been measured."""
     nothing = np.empty(0, np.float32)
-    return Beyond(np.empty(0, np.int64), nothing, nothing, nothing)
+    return Beyond(np.empty(0, np.int64), nothing, nothing, nothing, nothing)
 
 
 def mean_beyond(short: Floats, variance: Floats, scale: Floats) -> Floats:
@@ -145,7 +150,13 @@ def follow_beyond(
     more = np.where(short > 0, mean_beyond(short, variance, scale[: len(rising)]), 0.0)
     flat[rising] += (more / seconds).astype(np.float32)
     untold = np.where(short > 0, short + more, 0.0)
-    risen = Beyond(rising, told.astype(np.float32), untold.astype(np.float32), variance)
+    risen = Beyond(
+        rising,
+        told.astype(np.float32),
+        untold.astype(np.float32),
+        variance,
+        bound[rising].astype(np.float32),
+    )
 
     stayed = _follow_staying(
         staying,
@@ -189,8 +200,11 @@ def _follow_staying(
     # The floor at the segment's start (K7) raises what events lead below the bound.
     raised = np.maximum(bound - net - before.level - before.unheard, 0.0)
     kept = np.where(heard, _TOLD * before.unheard, before.unheard)
+    highest = np.where(heard, bound, np.maximum(bound, before.bound))
     level = before.level + (before.unheard - kept) + raised + net
-    unheard = np.maximum(bound + mean_beyond(bound - level, variance, scale) - level, 0.0)
+    unheard = np.maximum(highest + mean_beyond(highest - level, variance, scale) - level, 0.0)
     unheard = np.where(heard, np.minimum(unheard, kept), unheard)
-    after = before.pixels, level.astype(np.float32), unheard.astype(np.float32), variance.astype(np.float32)
-    return _Stayed(Beyond(*after), (unheard - kept).astype(np.float32))
+    after = Beyond(
+        before.pixels, *(plane.astype(np.float32) for plane in (level, unheard, variance, highest))
+    )
+    return _Stayed(after, (unheard - kept).astype(np.float32))
