@@ -567,9 +567,8 @@ def bridged(pixel, settings, times, on, off, scales):
             bounds.append(max(bound, right[0]))
 
     def follow_beyond():  # K7: by how much more than events, and bounds, say L rises beyond white in every interval
-        risen = (
-            None  # the level to which events have led, how far above it L is, the variance of that, the bound
-        )
+        # The level to which events have led, how far above it L is, the variance of that, and the bound.
+        risen = None
         most = ev.quantisation_variance * c2 if settings.filter.unshown_tail > 0 else 0
         for k, interval in enumerate(intervals[1:-1], 1):
             a, b, left, right, *_, gain, _ = interval

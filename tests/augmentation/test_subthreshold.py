@@ -249,3 +249,12 @@ def test_light_turns_where_events_of_both_signs_come():
     on, off = np.array([[3.0, 2.0, 4.0, 0.0]], np.float32), np.array([[1.0, 2.0, 0.0, 0.0]], np.float32)
     assert turns(on, off) == pytest.approx(2.0)
     assert turns(0 * on, 0 * off) == 0
+
+
+def test_a_pixel_that_a_frame_clips_changes_as_those_around_it():
+    """K7 asks by how much it may have risen beyond white."""
+    clipped = np.zeros(SHAPE, bool)
+    clipped[20, 30] = True
+    found = changes(0.05, variance=1e-8, clipped=clipped)
+    assert found[20, 30] == pytest.approx(0.05**2, rel=1e-3)
+    assert found[20, 30] == pytest.approx(found[5, 5], rel=1e-3)

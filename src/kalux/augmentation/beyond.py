@@ -91,7 +91,7 @@ def mean_beyond(short: Floats, variance: Floats, scale: Floats) -> Floats:
     The mean of a normal distribution about that level times the exponential one, cut off at the bound, less the bound.
     float64.
     """
-    from scipy.special import erfcx  # takes longer than all else of kalux that a command imports at once
+    from scipy.special import erfcx  # a tenth of a second, which what never clips need not wait for
 
     deviation = np.sqrt(np.asarray(variance, np.float64))
     cut = short / deviation + deviation / scale
@@ -136,13 +136,13 @@ def follow_beyond(
     staying = before.where(kept)
     scale = np.maximum(expected(np.concatenate((rising, staying.pixels))), _LEAST_SCALE)
     seconds = np.float32((segment.end - segment.start) * 1e-6)
-    slope = segment.slope.astype(np.float32, copy=True)
+    slope = segment.slope.copy()
     flat = slope.reshape(-1)
     planes = segment.augmented, segment.net, segment.events, second.value, change
-    augmented, net, events, bound, unheard = (plane.reshape(-1) for plane in planes)
+    augmented, net, events, bound, changes = (plane.reshape(-1) for plane in planes)
 
     def unheard_at(pixels: NDArray[np.int64]) -> NDArray[np.float32]:
-        return np.clip(unheard[pixels], _LEAST_CHANGE, quantisation_variance).astype(np.float32)
+        return np.clip(changes[pixels], _LEAST_CHANGE, quantisation_variance).astype(np.float32)
 
     # What rises has been led to its bound, and no further, where events fall short of it.
     told, short = augmented[rising] + net[rising], flat[rising] * seconds
@@ -158,7 +158,7 @@ def follow_beyond(
         bound[rising].astype(np.float32),
     )
 
-    stayed = _follow_staying(
+    stayed, grown = _follow_staying(
         staying,
         net[staying.pixels],
         events[staying.pixels] > 0,
@@ -166,21 +166,14 @@ def follow_beyond(
         np.minimum(staying.variance + unheard_at(staying.pixels), np.float32(quantisation_variance)),
         scale[len(rising) :],
     )
-    flat[staying.pixels] += stayed.grown / seconds
-    return segment._replace(slope=slope), risen.and_of(stayed.after)
-
-
-class _Stayed(NamedTuple):
-    """Pixels that stay clipped, at the end of a segment, and by how much what is unheard of them has grown."""
-
-    after: Beyond
-    grown: NDArray[np.float32]
+    flat[staying.pixels] += grown / seconds
+    return segment._replace(slope=slope), risen.and_of(stayed)
 
 
 def _follow_staying(
     before: Beyond, net: Floats, heard: NDArray[np.bool_], bound: Floats, variance: Floats, scale: Floats
-) -> _Stayed:
-    """Pixels that the frames at both ends clip.
+) -> tuple[Beyond, NDArray[np.float32]]:
+    """Pixels that the frames at both ends clip, and by how much what is unheard of them has grown.
 
     Parameters
     ----------
@@ -207,4 +200,4 @@ def _follow_staying(
     after = Beyond(
         before.pixels, *(plane.astype(np.float32) for plane in (level, unheard, variance, highest))
     )
-    return _Stayed(after, (unheard - kept).astype(np.float32))
+    return after, (unheard - kept).astype(np.float32)

@@ -11,6 +11,8 @@ their borders are steep.
 
 from __future__ import annotations
 
+import dataclasses
+import functools
 import operator
 from typing import Any, Final, NamedTuple
 
@@ -101,7 +103,8 @@ bounds lie an excess lower, and noise of bounds, which both have, changes little
 _NEIGHBOURHOOD: Final = np.ones((3, 3), np.uint8)
 
 
-class FrameHighlights(NamedTuple):
+@dataclasses.dataclass(frozen=True)
+class FrameHighlights:
     """What a frame shows of highlights.
 
     Attributes
@@ -121,10 +124,15 @@ class FrameHighlights(NamedTuple):
     measured: NDArray[np.bool_]
     pitch: int = 1
 
-    @property
+    @functools.cached_property
     def just_below(self) -> NDArray[np.bool_]:
         """(H, W) pixels just below white."""
         return self.measured & (self.darker < _NEAR)
+
+    @functools.cached_property
+    def hardness(self) -> Floats:
+        """`border_hardness`, which K7 and K15 ask for."""
+        return border_hardness(self)
 
 
 class Tail(NamedTuple):
@@ -170,7 +178,7 @@ def begin_unshown(first: Latent, highlights: FrameHighlights, tail: Tail) -> Uns
     parts = part_grid(first.value.shape)
     revealed = Revealed(np.zeros(parts), np.zeros(parts), np.zeros(parts), 0.0, 0.0)
     near, clipped = _counts(highlights)
-    hardness = border_hardness(highlights)
+    hardness = highlights.hardness
     excess = excess_from_surroundings(highlights, hardness, pixels, near / max(clipped, 1), tail)
     expected = np.float32(tail.times) * excess
     doubt = (np.float32(_UNKNOWN_SCALE) * expected) ** 2
@@ -234,7 +242,7 @@ def follow_unshown(
     )
     unknown, excess = pixels[~measured], memory.excess[~measured]
     raised = (bounded > predicted + _RAISED)[~measured]
-    hardness = border_hardness(highlights)
+    hardness = highlights.hardness
     if raised.any():
         around = excess_from_surroundings(highlights, hardness, unknown[raised], near / max(clipped, 1), tail)
         excess[raised] = np.minimum(excess[raised], around)
@@ -348,7 +356,7 @@ def expected_of_shown(
     As far as those that none has measured (``memory``, before that frame), but for being beside a border, since it is
     known from where they have come.
     """
-    hardness = border_hardness(highlights)
+    hardness = highlights.hardness
     below, clipped = _counts(highlights)
     level = _excess_around(highlights, hardness, below / max(clipped, 1), tail)
     excess = interpolated(level.astype(np.float32), pixels, memory.shape[1])
