@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from kalux import EVENT_DTYPE, Frame, Recording
 from kalux.calibration import moving_noise
-from kalux.calibration.frame_noise import usual_noise
-from kalux.calibration.moving_noise import MovingNoise, estimate_moving_noise
+from kalux.calibration.frame_noise import noise_at, usual_noise
+from kalux.calibration.moving_noise import MovingNoise, estimate_moving_noise, told_by_motion
 from kalux.calibration.noise import calibrate_noise
 from kalux.models.camera import Response
 from kalux.planning import plan
@@ -130,6 +130,33 @@ def test_noise_is_contradicted_by_far_less(read, shot, times):
     assert noise.contradicts(times * noise.read, times**2 * shot) == (times > 1.4) or times == pytest.approx(
         1.4
     )
+
+
+def test_what_scatters_counts_only_against_more(monkeypatch):
+    """What is left of a texture makes it too large, so that noise which seems to be far more is less."""
+
+    def told(scatter, otherwise, *, is_seen):
+        found = MovingNoise(0.002, 0.0, scatter, (0.05, 0.5))
+        monkeypatch.setattr(moving_noise, "estimate_moving_noise", lambda *_: found)
+        return told_by_motion(None, CAMERA, (otherwise, 0.0), is_seen=is_seen) is not None
+
+    assert not told(0.6, 0.0025, is_seen=True)
+    assert not told(0.6, 0.0025, is_seen=False)
+    assert not told(0.6, 0.001, is_seen=False)
+    assert told(0.6, 0.004, is_seen=True)
+    assert told(0.6, 0.004, is_seen=False)
+    assert told(0.2, 0.001, is_seen=False)
+    assert not told(0.2, 0.001, is_seen=True)
+
+
+def test_a_strong_texture_that_creeps_is_not_the_noise_of_frames():
+    """All that is told of it scatters, and yet is nearer than what parts allow that change smoothly."""
+    creeps = filmed(0.5, 0.001, 0.0, step=(0.25, 0.06), frames=24)
+    assert not estimate_moving_noise(creeps, CAMERA).is_certain
+    usual, true = usual_noise(creeps, CAMERA), np.hypot(0.001, LEVEL)
+    told = told_by_motion(creeps, CAMERA, (usual.read, usual.shot), is_seen=False)
+    assert noise_at(usual.read, usual.shot, 0.6) > 1.5 * true
+    assert 0.75 * true < noise_at(told.read, told.shot, 0.6) < 1.25 * true
 
 
 @given(st.floats(0.0, 0.999))

@@ -69,8 +69,8 @@ _MOST_TEXTURE: Final = 0.95  # share k beyond which nothing is told apart
 _TINY: Final = 1e-9  # variance, white = 1: below the rounding of 14 bits
 
 _SCATTERED: Final = 0.45
-"""Relative deviation of parts from the fit from which it tells nothing: 0.17 to 0.33 where noise is all there is (a
-part of 100 pixels has some 60 independent values); beyond 0.45, it is up to 3.8 times too much."""
+"""Relative deviation of parts from the fit from which it is a bound alone: 0.17 to 0.33 where noise is all there is (a
+part of 100 pixels has some 60 independent values); beyond 0.45 it is mostly more than there is, up to 12 times."""
 
 _BEYOND: Final = 1.4
 """Noise, in units of this, from which it is contradicted: of 89 recordings without a fixed pattern this is 0.95 to 1.16
@@ -153,17 +153,27 @@ def _is_grey(frame: Frame) -> bool:
 
 
 def told_by_motion(
-    recording: Recording, camera: CameraSettings, still: tuple[float, float] | None
+    recording: Recording, camera: CameraSettings, otherwise: tuple[float, float], *, is_seen: bool
 ) -> MovingNoise | None:
-    """The noise of what moves, where it is certain, of a sensor without a fixed pattern.
+    """The noise of what moves, where it counts, of a sensor without a fixed pattern.
 
-    ``still``: read and shot noise that what stands still seems to have, which is taken where it is not contradicted, so
-    that the answer is None; None: nothing does. Others as of `estimate_moving_noise`.
+    It does where nothing else has been seen of the noise and it is certain; and where it is far less than what counts
+    otherwise, however much it scatters: what is left of a texture makes it too large.
+
+    Parameters
+    ----------
+    recording, camera
+        As of `estimate_moving_noise`.
+    otherwise
+        Read and shot noise that count otherwise.
+    is_seen
+        Whether these are of what stands still, and not the usual.
     """
     moving = estimate_moving_noise(recording, camera)
-    if moving is None or not moving.is_certain:
+    if moving is None:
         return None
-    return moving if still is None or moving.contradicts(*still) else None
+    counts = moving.contradicts(*otherwise) or (moving.is_certain and not is_seen)
+    return moving if counts else None
 
 
 class _Parts(NamedTuple):

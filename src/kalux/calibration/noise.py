@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from kalux.calibration.black_level import with_known_black
 from kalux.calibration.delay import estimate_delay
 from kalux.calibration.fixed_pattern import FixedPattern, estimate_fixed_pattern
-from kalux.calibration.frame_noise import FrameNoise, estimate_frame_noise, noise_at
+from kalux.calibration.frame_noise import FrameNoise, estimate_frame_noise, noise_at, usual_noise
 from kalux.calibration.global_thresholds import Usual, with_true_delay
 from kalux.calibration.hot_pixels import find_hot_pixels
 from kalux.calibration.levels import ClippingLevels, clipping_levels
@@ -197,8 +197,9 @@ def calibrate_noise(
     pattern = estimate_fixed_pattern(recording, camera)
     moving = None
     if pattern is not None and pattern.is_measured and pattern.deviation == 0 and not is_compressed:
-        still = None if frames is None or not frames.is_reliable else (frames.read, frames.shot)
-        moving = told_by_motion(recording, camera, still)
+        still = frames if frames is not None and frames.is_reliable else None
+        noise = usual_noise(recording, camera) if still is None else still
+        moving = told_by_motion(recording, camera, (noise.read, noise.shot), is_seen=still is not None)
     return NoiseCalibration(
         hot=hot,
         events=event_noise(recording, known_hot=hot),

@@ -98,7 +98,7 @@ def with_moving_noise(
     filled, camera = of_frames._replace(settings=settings), settings.camera
     if of_frames.was_given or compression is not None or camera.fixed_pattern != 0:
         return filled
-    moving = told_by_motion(recording, camera, None if of_frames.estimate is None else camera.noise)
+    moving = told_by_motion(recording, camera, camera.noise, is_seen=of_frames.estimate is not None)
     if moving is None:
         return filled
     settings = altered(settings, "camera", frame_noise=moving.read, shot_noise=moving.shot)
