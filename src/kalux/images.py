@@ -13,7 +13,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.augmentation.along import Along, joined_along, put, taken
+from kalux.augmentation.along import Along, joined_along, log_taken, put, put_intensity, taken
 from kalux.augmentation.bridge import RANDOM
 from kalux.augmentation.highlights import Unshown
 from kalux.augmentation.motion import Paths
@@ -337,14 +337,8 @@ def _look_along(
     intensity: NDArray[np.float32], variance: NDArray[np.float32], along: Along, log_offset: float
 ) -> None:
     """Join an image with what the frames around show along the paths of what moves (K16). In place."""
-    offset = np.float32(log_offset)
-    level = taken(along, intensity)
-    level += offset
-    np.log(level, out=level)
-    joined, doubt = joined_along(along, level, taken(along, variance))
-    np.exp(joined, out=joined)
-    joined -= offset
-    put(along, intensity, np.maximum(joined, np.float32(0.0), out=joined))
+    level, doubt = joined_along(along, log_taken(along, intensity, log_offset), taken(along, variance))
+    put_intensity(along, intensity, level, log_offset)
     put(along, variance, doubt)
 
 

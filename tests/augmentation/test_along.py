@@ -9,7 +9,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kalux.augmentation.along import Along, Motion, as_seen, put, taken, unmoved_difference
+from kalux.augmentation.along import (
+    Along,
+    Motion,
+    as_seen,
+    log_taken,
+    put,
+    put_intensity,
+    taken,
+    unmoved_difference,
+)
 from kalux.augmentation.bridge import UNMEASURED, Latent
 from kalux.augmentation.resampling import readable
 from textures import SHAPE, frame_of, texture, whole
@@ -177,6 +186,21 @@ def test_windows_are_taken_with_their_margins_and_put_back_without():
     for window in windows:
         expected[window] = image[window]
     np.testing.assert_array_equal(found, expected)
+
+
+def test_an_image_is_looked_along_by_its_log_intensity():
+    image = np.geomspace(1e-4, 50.0, 20 * 30, dtype=np.float32).reshape(20, 30)
+    nothing = np.zeros((2, *image.shape), np.float32)
+    windows = ((slice(2, 18), slice(3, 20)),)
+    along = Along(Motion(nothing, nothing, nothing, nothing, image, image, 0.04, windows), 0.5)
+    level = log_taken(along, image, 0.01)
+    np.testing.assert_allclose(level, np.log(taken(along, image).astype(np.float64) + 0.01), atol=1e-6)
+    found = image.copy()
+    put_intensity(along, found, level - 1.0, 0.01)
+    expected = image.copy()
+    expected[windows[0]] = np.maximum((image[windows[0]] + 0.01) / np.e - 0.01, 0.0)
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-7)
+    assert found.min() == 0.0
 
 
 def test_a_black_pixel_measures_nothing_and_a_frame_may_be_in_float64():

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from kalux import memory
 from kalux.augmentation.bridge import UNMEASURED, Latent, bridge_variance
 from kalux.augmentation.resampling import BORDER, read_row
-from kalux.compiled import FUSED, ONE, empty, loop
+from kalux.compiled import FUSED, ONE, ZERO, empty, exponential, larger, logarithm, loop
 from kalux.formulas import Number, Pixels, Row, choose, formula, larger_of, row_formula, squared
 
 Floats = NDArray[np.floating[Any]]
@@ -233,6 +233,25 @@ def put(along: Along, plane: Plane, values: Plane) -> None:
     """Fill the windows of a plane with values that were `taken`. In place."""
     places = along.motion.places
     _put(plane.reshape(-1), np.uint64(plane.shape[1]), places.looked_at, places.changed, values)
+
+
+def log_taken(along: Along, intensity: Plane, log_offset: float) -> Plane:
+    """log(I + I_0) of what is `taken` from an image."""
+    places = along.motion.places
+    values = memory.empty((places.pixels,))
+    width, offset = np.uint64(intensity.shape[1]), np.float32(log_offset)
+    _take_log(intensity.reshape(-1), width, places.looked_at, offset, values)
+    return values
+
+
+def put_intensity(along: Along, intensity: Plane, log_intensity: Plane, log_offset: float) -> None:
+    """Fill the windows of an image with what was `log_taken`, which becomes the light that it is, at least black. In
+    place."""
+    places = along.motion.places
+    width, offset = np.uint64(intensity.shape[1]), np.float32(log_offset)
+    _put_intensity(
+        intensity.reshape(-1), width, places.looked_at, places.changed, offset, log_intensity
+    )
 
 
 def _look(
@@ -545,6 +564,20 @@ def _take(plane, width, windows, values):  # type: ignore[no-untyped-def]
             for i in range(count):
                 values[at + i] = plane[place + i]
             at += count
+
+
+@loop
+def _take_log(intensity, width, windows, log_offset, values):  # type: ignore[no-untyped-def]
+    _take(intensity, width, windows, values)
+    for i in range(np.uint64(len(values))):
+        values[i] = logarithm(values[i] + log_offset)
+
+
+@loop
+def _put_intensity(intensity, width, windows, changed, log_offset, log_intensity):  # type: ignore[no-untyped-def]
+    for i in range(np.uint64(len(log_intensity))):
+        log_intensity[i] = larger(exponential(log_intensity[i]) - log_offset, ZERO)
+    _put(intensity, width, windows, changed, log_intensity)
 
 
 @loop

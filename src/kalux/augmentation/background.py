@@ -91,10 +91,19 @@ def doubt(
     and ``dark`` (H, W) what the step of a dark pixel has in addition (K20).
     """
     c2, q = np.float32(threshold2), np.float32(step_variance / threshold2)
-    on, off = (c2 * (np.float32(1.0) - f) * (f - q) for f in shares)
-    if dark is None:
-        return on, off
-    return on + shares[0] * dark, off + shares[1] * dark
+    found = apart(2, shares[0].shape)
+    of_dark = np.zeros(1, np.float32) if dark is None else dark.reshape(-1)
+    for share, more in zip(shares, found, strict=True):
+        _doubt(share.reshape(-1), q, c2, of_dark, more.reshape(-1))
+    return found[0], found[1]
+
+
+@loop
+def _doubt(shares, q, c2, dark, more):  # type: ignore[no-untyped-def]
+    every = len(dark) > 1
+    for i in range(np.uint64(len(more))):
+        f = shares[i]
+        more[i] = c2 * (np.float32(1.0) - f) * (f - q) + f * (dark[i] if every else dark[0])
 
 
 def _around(counts: NDArray[np.float32]) -> NDArray[np.float32]:

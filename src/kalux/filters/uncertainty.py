@@ -19,7 +19,7 @@ from kalux.augmentation.subthreshold import UNKNOWN_CHANGE, told_by_none
 from kalux.compiled import FUSED, ZERO, empty, larger, loop, smaller, zeros
 from kalux.filters.readout import CORRELATED, Subthreshold
 from kalux.models.dark_levels import DarkDoubt
-from kalux.models.lag import lag_growth
+from kalux.models.lag import lag_growth_at
 
 Array = NDArray[np.floating[Any]]
 
@@ -366,17 +366,18 @@ def add_lag(variance: NDArray[np.float32], intensity: Array, around: Around, lag
     lag_variance
         At `kalux.models.lag.LEVEL`; elsewhere as `kalux.models.lag.lag_growth` has it.
     """
-    planes = lag_growth(intensity), *around[:3]
+    planes = np.ascontiguousarray(intensity, np.float32), *around[:3]
     most = np.float32(LAG_HALF_WAY * bridge_variance(around.share) * lag_variance)
     _add_lag(variance.reshape(-1), *(plane.reshape(-1) for plane in planes), most)
 
 
 @loop(fastmath=FUSED)
-def _add_lag(variance, growth, first, second, events, most):  # type: ignore[no-untyped-def]
+def _add_lag(variance, intensity, first, second, events, most):  # type: ignore[no-untyped-def]
     unmeasured = np.float32(UNMEASURED)
     for i in range(np.uint64(len(variance))):
         tells = (events[i] > ZERO) & (smaller(np.float32(first[i]), np.float32(second[i])) < unmeasured)
-        variance[i] += most * growth[i] if tells else ZERO
+        more = most * lag_growth_at(intensity[i])
+        variance[i] += more if tells else ZERO
 
 
 def add_pattern(

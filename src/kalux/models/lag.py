@@ -7,7 +7,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.compiled import larger, loop
+from kalux.compiled import inner, larger, loop
 
 LEVEL: Final = 0.02
 """Intensity, white = 1, at which it is stated: darker than most of a scene, and not yet the noise of frames."""
@@ -28,8 +28,14 @@ def lag_growth(intensity: NDArray[Any]) -> NDArray[np.float32]:
     return growth
 
 
+@inner
+def lag_growth_at(intensity):  # type: ignore[no-untyped-def]
+    """`lag_growth` at one intensity, float32."""
+    share = np.float32(LEVEL) / larger(intensity, np.float32(DARKEST))
+    return share * np.sqrt(share)
+
+
 @loop
 def _fill_growth(intensity, growth):  # type: ignore[no-untyped-def]
-    for i in range(len(growth)):
-        share = np.float32(LEVEL) / larger(intensity[i], np.float32(DARKEST))
-        growth[i] = share * np.sqrt(share)
+    for i in range(np.uint64(len(growth))):
+        growth[i] = lag_growth_at(intensity[i])
