@@ -20,7 +20,7 @@ from kalux.calibration.moving_noise import MovingNoise
 from kalux.models.dark_levels import LIGHT_EDGES, dark_shares
 from kalux.models.dark_steps import BRIGHT, dark_steps
 from kalux.recording import Recording, less_black
-from kalux.settings import AUTO, EventSettings, Settings
+from kalux.settings import AUTO, USUAL_PATTERN, EventSettings, Settings
 from kalux.wording import how_many
 
 if TYPE_CHECKING:
@@ -113,6 +113,8 @@ def _of_frames(recording: Recording, plan: Plan, asked: Settings) -> Iterator[tu
         yield "noise", f"of frames {read:.2g} of white in the dark, {half:.2g} at half of it ({how})"
     if camera.fixed_pattern is not None:
         how = _estimated(asked.camera.fixed_pattern, plan.fixed_pattern is not None)
+        if how == _USUAL and 0 < camera.fixed_pattern < USUAL_PATTERN:
+            how = "nothing moves that could tell it; no more is in smooth parts"
         if camera.fixed_pattern:
             yield "pattern", f"fixed, of frames {camera.fixed_pattern:.2g} of white ({how})"
         else:

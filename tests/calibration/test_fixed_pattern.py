@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from kalux import EVENT_DTYPE, Frame, Recording
-from kalux.calibration.fixed_pattern import FixedPattern, estimate_fixed_pattern
+from kalux.calibration.fixed_pattern import FixedPattern, estimate_fixed_pattern, largest_pattern
 from kalux.models.camera import Response
 from kalux.settings import CameraSettings
 
@@ -65,6 +65,52 @@ def test_what_stands_still_may_be_the_scene():
     found = estimate_fixed_pattern(recorded(pattern(0.01), step=(0, 0)), CAMERA)
     assert found.deviation == 0
     assert not found.is_measured
+
+
+@pytest.mark.parametrize("name", ["linear", "srgb"])
+@pytest.mark.parametrize("deviation", [0.0, 0.002, 0.006])
+def test_smooth_parts_of_a_still_scene_say_what_the_pattern_is_at_most(name, deviation):
+    """As stored, whatever the response; of no pattern it is what is left of the noise in the mean of the frames."""
+    smooth = cv2.GaussianBlur(scene(300, 300), (0, 0), 4)
+    stored = Response.named(name)(smooth)
+    still = recorded(pattern(deviation), step=(0, 0), image=stored)
+    most = largest_pattern(still, CameraSettings(response=name))
+    left = np.sqrt((0.003**2 + (1 / 255) ** 2 / 12) / 20)
+    assert most == pytest.approx(np.hypot(deviation, left), rel=0.15)
+
+
+def test_a_texture_bounds_the_pattern_by_less_than_itself_or_not_at_all():
+    assert largest_pattern(recorded(pattern(0.003), step=(0, 0)), CAMERA) > 0.9 * 0.003
+    few = Recording.from_arrays(
+        NOTHING, [Frame(np.full((30, 40), 90, np.uint8), 0, 10_000)], sensor_size=(30, 40)
+    )
+    assert largest_pattern(few, CAMERA) == np.inf
+
+
+def test_smooth_parts_of_a_mosaic_are_those_of_one_colour_and_none_that_clip():
+    colours = np.tile([[0.2, 0.4], [0.3, 0.6]], (60, 80))
+    offset = pattern(0.003)
+    masked = np.arange(SIZE[1]) >= 20
+    frames = []
+    for k in range(10):
+        values = np.rint(255 * (colours + offset)).astype(np.uint8)
+        values[100:] = (255 * np.random.default_rng(k).random((20, 160))).astype(np.uint8)
+        values[::7, 150:] = 255
+        frames.append(Frame(values, 40_000 * k, 40_000 * k + 10_000, mosaic="RGGB"))
+    found = largest_pattern(Recording.from_arrays(NOTHING, frames, sensor_size=SIZE), CAMERA)
+    assert found == pytest.approx(np.hypot(0.003, 1 / 255 / np.sqrt(12)), rel=0.15)
+    spoilt = [
+        Frame(
+            np.where(masked, f.image, np.random.default_rng(9).integers(20, 200, SIZE)).astype(np.uint8),
+            f.exposure_start,
+            f.exposure_end,
+            mosaic="RGGB",
+            valid=np.broadcast_to(masked, SIZE),
+        )
+        for f in frames
+    ]
+    with_mask = largest_pattern(Recording.from_arrays(NOTHING, spoilt, sensor_size=SIZE), CAMERA)
+    assert with_mask == pytest.approx(found, rel=0.1)
 
 
 def test_clipped_and_masked_pixels_do_not_count():

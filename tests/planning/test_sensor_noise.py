@@ -43,6 +43,25 @@ def test_the_frame_noise_comes_from_the_frames_and_can_be_given():
     assert paper.camera.frame_noise is None  # it has a confidence instead
 
 
+def test_where_nothing_moves_the_pattern_is_the_usual_one_or_less_where_smooth_parts_show_less():
+    rng = np.random.default_rng(0)
+    ramp = np.linspace(20, 150, 60)[:, None]
+
+    def still(deviation):
+        offset = rng.normal(0, deviation, (60, 80))
+        frames = [
+            Frame((ramp + offset).round().astype(np.uint8), 50_000 * k, 50_000 * k + 1000) for k in range(10)
+        ]
+        return plan(
+            Recording.from_arrays(np.empty(0, EVENT_DTYPE), frames, sensor_size=offset.shape), at="frames"
+        )
+
+    usual, less = still(4.0), still(0.6)
+    assert (usual.settings.camera.fixed_pattern, usual.fixed_pattern) == (0.005, None)
+    assert less.settings.camera.fixed_pattern == pytest.approx(np.hypot(0.6, 0.29) / 255, rel=0.2)
+    assert less.fixed_pattern is None
+
+
 def test_the_fixed_pattern_comes_from_the_frames_and_can_be_given():
     rng = np.random.default_rng(0)
     ramp, offset = np.linspace(20, 150, 60), rng.normal(0, 2, (60, 80))

@@ -249,9 +249,7 @@ def put_intensity(along: Along, intensity: Plane, log_intensity: Plane, log_offs
     place."""
     places = along.motion.places
     width, offset = np.uint64(intensity.shape[1]), np.float32(log_offset)
-    _put_intensity(
-        intensity.reshape(-1), width, places.looked_at, places.changed, offset, log_intensity
-    )
+    _put_intensity(intensity.reshape(-1), width, places.looked_at, places.changed, offset, log_intensity)
 
 
 def _look(

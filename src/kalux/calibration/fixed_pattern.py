@@ -10,13 +10,15 @@ Offsets are those of stored values: of a response that bends, each is as much li
 
 from __future__ import annotations
 
+import math
 from itertools import islice
 from typing import Final, NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.calibration.frame_noise import MAX_FRAMES
+from kalux.calibration.frame_noise import MAX_FRAMES, by_level, smoothest
 from kalux.calibration.intervals import camera_of
 from kalux.calibration.regression import grid_step, parts, ratio_error
 from kalux.compiled import larger, loop, smaller
@@ -119,6 +121,40 @@ def estimate_fixed_pattern(recording: Recording, camera: CameraSettings) -> Fixe
     beside: Array = np.zeros((2, 2))
     _add_products(*planes, apart, part, sums, beside)
     return _solved(sums, beside)
+
+
+def largest_pattern(recording: Recording, camera: CameraSettings) -> float:
+    """Standard deviation of stored values, white = 1, that the pattern does not exceed, whatever stands still.
+
+    The mean of the first 32 frames has all of the pattern, and in its smoothest parts little else: what
+    `kalux.calibration.frame_noise.smoothest` finds there. Infinite where too few parts are from 0.01 of white on, and
+    not clipped, in all of these frames.
+
+    Parameters
+    ----------
+    recording
+        With frames and exposures, not in colour.
+    camera
+        Response and saturation.
+    """
+    model = camera_of(recording, camera)
+    stored = np.zeros(recording.sensor_size)
+    bad = np.zeros(recording.sensor_size, np.bool_)
+    count, pitch = 0, 1
+    for frame in islice(recording.frames(), _MOST_FRAMES):
+        shot = take_shot(frame, model, float(frame.exposure))
+        levels, intensity, clipped = by_level(shot)
+        unusable, pitch = clipped | (intensity <= _DARKEST), shot.pitch
+        count += 1
+        stored += np.where(unusable, 0.0, model.response(intensity))[levels]
+        bad |= unusable[levels] if shot.valid is None else unusable[levels] | ~shot.valid
+    # The filter reaches a pixel of the same colour on either side.
+    inside = np.zeros_like(bad)
+    inside[pitch:-pitch, pitch:-pitch] = True
+    reach = np.ones((2 * pitch + 1, 2 * pitch + 1), np.uint8)
+    usable = inside & ~cv2.dilate(bad.view(np.uint8), reach).view(np.bool_)
+    found = smoothest(stored / max(count, 1), usable, pitch)
+    return math.inf if found is None else found
 
 
 def _stored(around: Planes, response: Response) -> Planes:

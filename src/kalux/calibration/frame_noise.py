@@ -571,6 +571,19 @@ def typical_smooth_noise(found: list[SmoothNoise | None]) -> SmoothNoise | None:
     return SmoothNoise(*np.median(np.array(known), axis=0).tolist()) if known else None
 
 
+def smoothest(plane: Array, usable: NDArray[np.bool_], pitch: int) -> float | None:
+    """Standard deviation of the white noise that the smoothest parts of a plane would have, or more.
+
+    As of `smooth_noise`, of one plane, of which the parts count that are ``usable``. None: fewer than 20 parts are.
+    """
+    whole = square_parts(usable).all(1)
+    if np.count_nonzero(whole) < _LEAST_SMOOTH:
+        return None
+    beyond = cv2.filter2D(plane, cv2.CV_64F, _of_one_colour(WITHOUT_SLOPES, pitch))
+    squares = square_parts(beyond * beyond).mean(1)[whole]
+    return float(np.sqrt(np.quantile(squares, _SMOOTHEST))) / _OF_WHITE
+
+
 def square_parts(plane: NDArray[Any]) -> NDArray[Any]:
     """(N, 100) the pixels of every part; what is left over on the right and below is in none."""
     rows, columns = (length // PART for length in plane.shape)

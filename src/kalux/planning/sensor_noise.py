@@ -9,7 +9,7 @@ import numpy as np
 from kalux.calibration.compression import Compression
 from kalux.calibration.dark_shares import estimate_dark_shares
 from kalux.calibration.dark_steps import DarkSamples
-from kalux.calibration.fixed_pattern import FixedPattern, estimate_fixed_pattern
+from kalux.calibration.fixed_pattern import FixedPattern, estimate_fixed_pattern, largest_pattern
 from kalux.calibration.frame_noise import FrameNoise, UsualNoise, estimate_frame_noise, usual_noise
 from kalux.calibration.lag import Lag, LagSums
 from kalux.calibration.mismatch import Mismatch, estimate_mismatch
@@ -108,13 +108,15 @@ def with_moving_noise(
 def with_fixed_pattern(recording: Recording, settings: Settings) -> tuple[Settings, FixedPattern | None]:
     """Fill in the frames' fixed pattern, where the variance counts it: from the settings, else an estimate.
 
-    Where the recording cannot tell, because nothing moves, the usual one; 0 of frames in colour.
+    Where the recording cannot tell, because nothing moves, the usual one, or what smooth parts allow if that is less; 0
+    of frames in colour.
     """
     if settings.camera.fixed_pattern is not None or not settings.filter.joins_frames:
         return settings, None
     found = estimate_fixed_pattern(recording, settings.camera)
     if found is not None and not found.is_measured:
-        return altered(settings, "camera", fixed_pattern=USUAL_PATTERN), None
+        most = largest_pattern(recording, settings.camera)
+        return altered(settings, "camera", fixed_pattern=min(USUAL_PATTERN, most)), None
     return altered(settings, "camera", fixed_pattern=0.0 if found is None else found.deviation), found
 
 
