@@ -65,7 +65,8 @@ class CameraSettings:
     fixed_pattern
         Standard deviation of the offsets that stored values of frames' pixels keep from frame to frame, white = 1: the
         images have them, too, and their variance counts them (docs/equations.md, K11). None: an estimate from the
-        recording (`kalux.calibration.fixed_pattern`), `USUAL_PATTERN` where it cannot tell, and in a live stream.
+        recording (`kalux.calibration.fixed_pattern`); `USUAL_PATTERN` where that cannot tell and smooth parts have no
+        less, and in a live stream.
     confidence
         1 / sigma_im^2 of equation (6) as the paper uses it, a rate in 1/s: 7e5 (DAVIS), 7e7 (FLIR). For
         augmentation "paper" only.

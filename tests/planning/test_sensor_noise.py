@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from kalux import PRESETS, Frame, Recording, reconstruct
+from kalux.calibration.compression import Compression
 from kalux.calibration.refractory import counted_period
 from kalux.datasets import SensorSettings, demo_scene, simulate
 from kalux.events import EVENT_DTYPE
@@ -13,6 +14,7 @@ from kalux.models.dark_levels import dark_shares
 from kalux.models.dark_steps import dark_steps
 from kalux.plan_report import plan_report
 from kalux.planning import plan
+from kalux.planning.sensor_noise import with_fixed_pattern
 from kalux.settings import altered
 
 from builders import passing_by, recording, slow_scene, textured
@@ -43,23 +45,29 @@ def test_the_frame_noise_comes_from_the_frames_and_can_be_given():
     assert paper.camera.frame_noise is None  # it has a confidence instead
 
 
+def still_frames(deviation):
+    """A slope, with offsets of so many levels."""
+    offset = np.random.default_rng(0).normal(0, deviation, (60, 80))
+    image = (np.linspace(20, 150, 60)[:, None] + offset).round().astype(np.uint8)
+    frames = [Frame(image, 50_000 * k, 50_000 * k + 1000) for k in range(10)]
+    return Recording.from_arrays(np.empty(0, EVENT_DTYPE), frames, sensor_size=offset.shape)
+
+
 def test_where_nothing_moves_the_pattern_is_the_usual_one_or_less_where_smooth_parts_show_less():
-    rng = np.random.default_rng(0)
-    ramp = np.linspace(20, 150, 60)[:, None]
-
-    def still(deviation):
-        offset = rng.normal(0, deviation, (60, 80))
-        frames = [
-            Frame((ramp + offset).round().astype(np.uint8), 50_000 * k, 50_000 * k + 1000) for k in range(10)
-        ]
-        return plan(
-            Recording.from_arrays(np.empty(0, EVENT_DTYPE), frames, sensor_size=offset.shape), at="frames"
-        )
-
-    usual, less = still(4.0), still(0.6)
+    usual = plan(still_frames(4.0), at="frames")
     assert (usual.settings.camera.fixed_pattern, usual.fixed_pattern) == (0.005, None)
+    less = plan(still_frames(0.6), at="frames")
     assert less.settings.camera.fixed_pattern == pytest.approx(np.hypot(0.6, 0.29) / 255, rel=0.2)
     assert less.fixed_pattern is None
+    report = dict(plan_report(still_frames(0.6), less, PRESETS["default"]))
+    assert report["pattern"].endswith("(nothing moves that could tell it; no more is in smooth parts)")
+
+
+def test_smooth_parts_of_compressed_frames_bound_no_pattern():
+    settings = altered(PRESETS["default"], "camera", frame_noise=0.002)
+    for compression, expected in ((Compression(0.004), 0.005), (None, 0.0026)):
+        found, _ = with_fixed_pattern(still_frames(0.6), settings, compression)
+        assert found.camera.fixed_pattern == pytest.approx(expected, rel=0.1)
 
 
 def test_the_fixed_pattern_comes_from_the_frames_and_can_be_given():

@@ -18,12 +18,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.calibration.frame_noise import MAX_FRAMES, by_level, smoothest
+from kalux.calibration.frame_noise import LEAST_READ, MAX_FRAMES, by_level, smoothest
 from kalux.calibration.intervals import camera_of
 from kalux.calibration.regression import grid_step, parts, ratio_error
 from kalux.compiled import larger, loop, smaller
 from kalux.filters.shots import Shot, take_shot
-from kalux.models.camera import Response
+from kalux.models.camera import Response, rounding_error
 from kalux.recording import Recording
 from kalux.settings import USUAL_PATTERN, CameraSettings
 
@@ -127,25 +127,25 @@ def largest_pattern(recording: Recording, camera: CameraSettings) -> float:
     """Standard deviation of stored values, white = 1, that the pattern does not exceed, whatever stands still.
 
     The mean of the first 32 frames has all of the pattern, and in its smoothest parts little else: what
-    `kalux.calibration.frame_noise.smoothest` finds there. Infinite where too few parts are from 0.01 of white on, and
-    not clipped, in all of these frames.
+    `kalux.calibration.frame_noise.smoothest` finds there, or what rounding may hide. Infinite where too few parts are
+    from 0.01 of white on, and not clipped, in all of these frames.
 
     Parameters
     ----------
     recording
-        With frames and exposures, not in colour.
+        With frames and exposures, not in colour, nor compressed, which leaves less of what is fine.
     camera
         Response and saturation.
     """
     model = camera_of(recording, camera)
     stored = np.zeros(recording.sensor_size)
     bad = np.zeros(recording.sensor_size, np.bool_)
-    count, pitch = 0, 1
+    count, pitch, hidden = 0, 1, LEAST_READ
     for frame in islice(recording.frames(), _MOST_FRAMES):
         shot = take_shot(frame, model, float(frame.exposure))
         levels, intensity, clipped = by_level(shot)
         unusable, pitch = clipped | (intensity <= _DARKEST), shot.pitch
-        count += 1
+        count, hidden = count + 1, max(hidden, rounding_error(frame) / 3**0.5)
         stored += np.where(unusable, 0.0, model.response(intensity))[levels]
         bad |= unusable[levels] if shot.valid is None else unusable[levels] | ~shot.valid
     # The filter reaches a pixel of the same colour on either side.
@@ -154,7 +154,7 @@ def largest_pattern(recording: Recording, camera: CameraSettings) -> float:
     reach = np.ones((2 * pitch + 1, 2 * pitch + 1), np.uint8)
     usable = inside & ~cv2.dilate(bad.view(np.uint8), reach).view(np.bool_)
     found = smoothest(stored / max(count, 1), usable, pitch)
-    return math.inf if found is None else found
+    return math.inf if found is None else max(found, hidden)
 
 
 def _stored(around: Planes, response: Response) -> Planes:

@@ -119,7 +119,7 @@ _BEYOND_SMOOTH: Final = 1.4
 """Noise of still pixels, in units of that of parts that change smoothly, from which it is not noise alone. It is 1.2
 where there is nothing else, 1.05 to 1.22 on four recordings."""
 
-_LEAST_READ: Final = 0.5 / 65535
+LEAST_READ: Final = 0.5 / 65535
 """Least read noise of frames in floats, white = 1: the rounding of 16 bits, finer than any camera's."""
 
 _AT_HALF: Final = 2.0
@@ -238,8 +238,8 @@ def estimate_frame_noise(
         found = _with_growth(found, flat, smooth, camera, response)
     if smooth is not None:
         found = _bounded(found, smooth, float(_rounding(np.array([smooth.level]), frame, response)[0]))
-    read = max(found.read, rounding, _LEAST_READ)
-    return found._replace(read=read, shot=found.shot if found.shot > _LEAST_READ**2 else 0.0)
+    read = max(found.read, rounding, LEAST_READ)
+    return found._replace(read=read, shot=found.shot if found.shot > LEAST_READ**2 else 0.0)
 
 
 def _rounding(levels: Array, frame: Frame, response: Response) -> Array:
@@ -264,7 +264,7 @@ def _bounded(found: FrameNoise, smooth: SmoothNoise, rounding: float) -> FrameNo
 
     What seems still changes all the same then, as fine texture does that moves below the threshold.
     """
-    beyond = found.at(smooth.level) / max(smooth.deviation, rounding, _LEAST_READ)
+    beyond = found.at(smooth.level) / max(smooth.deviation, rounding, LEAST_READ)
     if beyond <= _BEYOND_SMOOTH:
         return found
     return found._replace(read=found.read / beyond, shot=found.shot / beyond**2)
@@ -542,8 +542,8 @@ def smooth_noise(change: FrameChange) -> SmoothNoise | None:
     found = np.sqrt(fine)
     first, after = (float(value) for value in np.quantile(found, (_SMOOTHEST, _NEXT_SMOOTHEST)))
     smoothest = found <= first
-    ratio = coarse[smoothest].mean() / max(fine[smoothest].mean(), _LEAST_READ**2)
-    growth = _growth(levels, fine) / max(first, _LEAST_READ) ** 2
+    ratio = coarse[smoothest].mean() / max(fine[smoothest].mean(), LEAST_READ**2)
+    growth = _growth(levels, fine) / max(first, LEAST_READ) ** 2
     return SmoothNoise(first, float(levels[smoothest].mean()), after, float(np.sqrt(ratio)), growth)
 
 
@@ -662,7 +662,7 @@ def _shot(read: float, at_half: float) -> float:
 def possible_read(recording: Recording, camera: CameraSettings, dark: float) -> float:
     """Noise in the dark: no less than the standard deviation of rounding."""
     rounding = common_rounding(next(iter(recording.frames())), _response(recording, camera)) / 3**0.5
-    return max(dark, rounding, _LEAST_READ)
+    return max(dark, rounding, LEAST_READ)
 
 
 def _response(recording: Recording, camera: CameraSettings) -> Response:

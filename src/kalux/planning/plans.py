@@ -202,7 +202,7 @@ def _planned(
     chosen = _with_exposure_and_response(recording, chosen, seen.exposures)
     chosen = _with_white_balance(recording, chosen)
     of_frames = with_frame_noise(recording, chosen, mended.mends.compression)
-    chosen, pattern = with_fixed_pattern(recording, of_frames.settings)
+    chosen, pattern = with_fixed_pattern(recording, of_frames.settings, mended.mends.compression)
     of_frames = with_moving_noise(recording, of_frames, chosen, mended.mends.compression)
     chosen = of_frames.settings
     chosen, dead_time = with_dead_time(recording, chosen)

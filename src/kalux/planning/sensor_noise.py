@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -105,17 +106,19 @@ def with_moving_noise(
     return FilledFrameNoise(settings, moving)
 
 
-def with_fixed_pattern(recording: Recording, settings: Settings) -> tuple[Settings, FixedPattern | None]:
+def with_fixed_pattern(
+    recording: Recording, settings: Settings, compression: Compression | None
+) -> tuple[Settings, FixedPattern | None]:
     """Fill in the frames' fixed pattern, where the variance counts it: from the settings, else an estimate.
 
-    Where the recording cannot tell, because nothing moves, the usual one, or what smooth parts allow if that is less; 0
-    of frames in colour.
+    Where the recording cannot tell, because nothing moves, the usual one, or what smooth parts allow, if that is less
+    and no ``compression`` has smoothed them; 0 of frames in colour.
     """
     if settings.camera.fixed_pattern is not None or not settings.filter.joins_frames:
         return settings, None
     found = estimate_fixed_pattern(recording, settings.camera)
     if found is not None and not found.is_measured:
-        most = largest_pattern(recording, settings.camera)
+        most = math.inf if compression is not None else largest_pattern(recording, settings.camera)
         return altered(settings, "camera", fixed_pattern=min(USUAL_PATTERN, most)), None
     return altered(settings, "camera", fixed_pattern=0.0 if found is None else found.deviation), found
 
