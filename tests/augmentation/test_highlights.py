@@ -27,6 +27,7 @@ from kalux.augmentation.highlights import (
     scale_of_all,
     weights_of_both,
 )
+from kalux.augmentation.parts import weighted_sums
 
 from builders import printed_on_threads
 
@@ -463,3 +464,26 @@ def test_what_was_known_of_the_scale_counts_after_the_next_frame():
         for tail in (TAIL, TAIL._replace(times=0.5))
     ]
     np.testing.assert_allclose(excess_at(seen[1]), excess_at(seen[0]) / 2, rtol=1e-6)
+
+
+@pytest.mark.parametrize("pitch", [1, 2])
+def test_the_hardness_of_borders_is_that_of_the_darkest_pixel_beside_those_beside_clipped_ones(pitch):
+    """One colour at a time, and no pixel that is masked."""
+    rng = np.random.default_rng(7)
+    shape = 16, 24
+    clipped = rng.random(shape) < 0.1
+    measured = ~clipped & (rng.random(shape) < 0.9)
+    darker = np.where(measured, rng.random(shape), 0.0).astype(np.float32)
+    sums = np.zeros((2, 2, 3))
+    for y, x in np.argwhere(measured):
+        around = np.s_[y % pitch :: pitch, x % pitch :: pitch]
+        row, column = y // pitch, x // pitch
+        near = np.s_[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2]
+        if clipped[around][near].any():
+            darkest = float(darker[around][near].max())
+            sums[:, y // 8, x // 8] += 1.0, darkest / (darkest + 0.05)
+    rims, hard = map(weighted_sums, sums)
+    found = border_hardness(FrameHighlights(clipped, darker, measured, pitch))
+    np.testing.assert_allclose(found, hard / rims, rtol=1e-6)
+    nothing = FrameHighlights(np.zeros(shape, bool), darker, measured, pitch)
+    assert (border_hardness(nothing) == 1.0).all()

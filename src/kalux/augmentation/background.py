@@ -15,12 +15,12 @@ from __future__ import annotations
 
 from typing import Any, Final
 
-import cv2
 import numpy as np
 from numba.core import types
 from numpy.typing import NDArray
 
-from kalux.compiled import apart, larger, loop, smaller
+from kalux import memory
+from kalux.compiled import apart, larger, loop, smaller, zeros
 from kalux.formulas import Number, formula
 
 Floats = NDArray[np.floating[Any]]
@@ -62,7 +62,7 @@ def signal_shares(
     hidden
         (H, W): pixels that neither frame around measures.
     """
-    counts = tuple(np.rint(events).astype(np.float32) for events in (on, off))
+    counts = tuple(np.ascontiguousarray(np.rint(events), np.float32) for events in (on, off))
     cells = tuple(np.empty(on.size, np.uint16) for _ in counts)
     found = np.zeros((2, 2 * _CELLS), np.int64)
     for own, cell in zip(counts, cells, strict=True):
@@ -108,11 +108,30 @@ def _doubt(shares, q, c2, dark, more):  # type: ignore[no-untyped-def]
 
 def _around(counts: NDArray[np.float32]) -> NDArray[np.float32]:
     """Events of the 24 pixels around each, those of the 8 nearest twice."""
-    nearest, near = (
-        cv2.boxFilter(counts, -1, (side, side), normalize=False, borderType=cv2.BORDER_CONSTANT)
-        for side in (3, 5)
-    )
-    return np.asarray(nearest + near - 2.0 * counts, np.float32)
+    near = memory.empty(counts.shape)
+    _sum_around(counts, near)
+    return near
+
+
+@loop
+def _sum_around(counts, near):  # type: ignore[no-untyped-def]
+    """Row by row: the sums of 3 and of 5 pixels of each column, with two empty ones on either side, then of these."""
+    height, width = counts.shape
+    of_3, of_5 = zeros(width + 4, np.float32), zeros(width + 4, np.float32)
+    two = np.uint64(2)
+    for row in range(height):
+        of_3[:], of_5[:] = np.float32(0.0), np.float32(0.0)
+        for other in range(larger(row - 2, 0), smaller(row + 3, height)):
+            for i in range(np.uint64(width)):
+                of_5[two + i] += counts[other, i]
+        for other in range(larger(row - 1, 0), smaller(row + 2, height)):
+            for i in range(np.uint64(width)):
+                of_3[two + i] += counts[other, i]
+        for i in range(np.uint64(width)):
+            one, three, four = i + np.uint64(1), i + np.uint64(3), i + np.uint64(4)
+            nearest = of_3[one] + of_3[i + two] + of_3[three]
+            all_near = of_5[i] + of_5[one] + of_5[i + two] + of_5[three] + of_5[four]
+            near[row, i] = nearest + all_near - np.float32(2.0) * counts[row, i]
 
 
 @loop

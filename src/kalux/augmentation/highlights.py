@@ -38,7 +38,7 @@ from kalux.augmentation.parts import (
     weighted_area,
     weighted_sums,
 )
-from kalux.compiled import larger, loop
+from kalux.compiled import larger, loop, smaller
 
 Floats = NDArray[np.floating[Any]]
 
@@ -392,16 +392,33 @@ def _distance(highlights: FrameHighlights) -> NDArray[np.float32]:
 
 def border_hardness(highlights: FrameHighlights) -> Floats:
     """Mean hardness, 0 to 1, of the borders of clipped pixels around every part; 1 where there are none."""
-    shape = highlights.clipped.shape
-    rim, hardness = np.zeros(shape, np.bool_), np.zeros(shape, np.float32)
-    for of_colour in _colours(highlights):
-        clipped = np.ascontiguousarray(highlights.clipped[of_colour], np.uint8)
-        beside = cv2.dilate(clipped, _NEIGHBOURHOOD).view(np.bool_) & highlights.measured[of_colour]
-        darkest = cv2.dilate(np.ascontiguousarray(highlights.darker[of_colour]), _NEIGHBOURHOOD)[beside]
-        rim[of_colour] = beside
-        hardness[of_colour][beside] = darkest / (darkest + np.float32(_SOFT))
-    rims, hard = (weighted_sums(part_sums(plane)) for plane in (rim, hardness))
+    pitch = highlights.pitch
+    of_colour = np.zeros((2 * pitch + 1, 2 * pitch + 1), np.uint8)
+    of_colour[::pitch, ::pitch] = 1
+    beside = (
+        cv2.dilate(np.ascontiguousarray(highlights.clipped, np.uint8), of_colour).view(np.bool_)
+        & highlights.measured
+    )
+    sums = np.zeros((2, *part_grid(beside.shape)))
+    _sum_borders(beside, np.ascontiguousarray(highlights.darker), pitch, sums)
+    rims, hard = map(weighted_sums, sums)
     return np.where(rims > 0.0, hard / np.maximum(rims, 1e-300), 1.0)
+
+
+@loop
+def _sum_borders(beside, darker, pitch, sums):  # type: ignore[no-untyped-def]
+    """Of every part: the pixels ``beside`` clipped ones, and the sum of how hard the border is at each."""
+    (height, width), part = darker.shape, np.int64(PART)
+    for row in range(height):
+        for column in range(width):
+            if not beside[row, column]:
+                continue
+            darkest, top, left = np.float32(0.0), row - pitch, column - pitch
+            for y in range(top if top >= 0 else row, smaller(row + pitch + 1, height), pitch):
+                for x in range(left if left >= 0 else column, smaller(column + pitch + 1, width), pitch):
+                    darkest = larger(darkest, darker[y, x])
+            sums[0, row // part, column // part] += 1.0
+            sums[1, row // part, column // part] += darkest / (darkest + np.float32(_SOFT))
 
 
 def _colours(highlights: FrameHighlights) -> list[tuple[slice, slice]]:

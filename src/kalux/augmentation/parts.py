@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.compiled import inner, larger, loop, smaller
+from kalux.compiled import inner, larger, loop, smaller, zeros
 
 Floats = NDArray[np.floating[Any]]
 
@@ -97,9 +97,26 @@ def weighted_sums(parts: Floats, farthest: int = ALL) -> Floats:
 
     Not as a product of matrices: the last bits of BLAS depend on the number of threads.
     """
-    below, beside = (_weights(min(n, farthest)) for n in parts.shape)
-    near = cv2.sepFilter2D(parts, cv2.CV_64F, beside, below, borderType=cv2.BORDER_CONSTANT)
-    return np.asarray(near, np.float64)
+    near = np.zeros(parts.shape)
+    _weigh(np.ascontiguousarray(parts, np.float64), *(_weights(min(n, farthest)) for n in parts.shape), near)
+    return near
+
+
+@loop
+def _weigh(parts, below, beside, near):  # type: ignore[no-untyped-def]
+    """Add up first the parts of each column, then of each row, beside which there are zeros."""
+    (height, width), reach, margin = parts.shape, len(below) // 2, len(beside) // 2
+    of_columns = zeros(width + 2 * margin, np.float64)
+    for row in range(height):
+        of_columns[:] = 0.0
+        for k in range(larger(reach - row, 0), smaller(len(below), height + reach - row)):
+            other, weight = row + k - reach, below[k]
+            for i in range(np.uint64(width)):
+                of_columns[np.uint64(margin) + i] += weight * parts[other, i]
+        for k in range(len(beside)):
+            weight, first = beside[k], np.uint64(k)
+            for i in range(np.uint64(width)):
+                near[row, i] += weight * of_columns[first + i]
 
 
 @functools.cache
