@@ -100,8 +100,6 @@ _LOWER_BOUNDS: Final = 8.0
 """How fast a direction of time counts less the lower its bounds are (docs/equations.md, K15): with 8 none counts whose
 bounds lie an excess lower, and noise of bounds, which both have, changes little."""
 
-_NEIGHBOURHOOD: Final = np.ones((3, 3), np.uint8)
-
 
 @dataclasses.dataclass(frozen=True)
 class FrameHighlights:
