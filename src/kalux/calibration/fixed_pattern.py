@@ -14,11 +14,17 @@ import math
 from itertools import islice
 from typing import Final, NamedTuple
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.calibration.frame_noise import LEAST_READ, MAX_FRAMES, by_level, smoothest
+from kalux.calibration.frame_noise import (
+    LEAST_READ,
+    MAX_FRAMES,
+    by_level,
+    inner_pixels,
+    near,
+    smoothest,
+)
 from kalux.calibration.intervals import camera_of
 from kalux.calibration.regression import grid_step, parts, ratio_error
 from kalux.compiled import larger, loop, smaller
@@ -149,10 +155,7 @@ def largest_pattern(recording: Recording, camera: CameraSettings) -> float:
         stored += np.where(unusable, 0.0, model.response(intensity))[levels]
         bad |= unusable[levels] if shot.valid is None else unusable[levels] | ~shot.valid
     # The filter reaches a pixel of the same colour on either side.
-    inside = np.zeros_like(bad)
-    inside[pitch:-pitch, pitch:-pitch] = True
-    reach = np.ones((2 * pitch + 1, 2 * pitch + 1), np.uint8)
-    usable = inside & ~cv2.dilate(bad.view(np.uint8), reach).view(np.bool_)
+    usable = inner_pixels(~near(bad, pitch), pitch)
     found = smoothest(stored / max(count, 1), usable, pitch)
     return math.inf if found is None else max(found, hidden)
 

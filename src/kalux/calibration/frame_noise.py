@@ -538,7 +538,8 @@ def smooth_noise(change: FrameChange) -> SmoothNoise | None:
     whole = square_parts(change.usable).all(1) & (levels > _DARK_PARTS[-1][-1])
     if np.count_nonzero(whole) < _LEAST_SMOOTH:
         return None
-    levels, fine, coarse = levels[whole], _beyond_slopes(change, 1)[whole], _beyond_slopes(change, 2)[whole]
+    levels = levels[whole]
+    fine, coarse = (_beyond_slopes(change.change, k * change.pitch)[whole] / 2 for k in (1, 2))
     found = np.sqrt(fine)
     first, after = (float(value) for value in np.quantile(found, (_SMOOTHEST, _NEXT_SMOOTHEST)))
     smoothest = found <= first
@@ -547,11 +548,10 @@ def smooth_noise(change: FrameChange) -> SmoothNoise | None:
     return SmoothNoise(first, float(levels[smoothest].mean()), after, float(np.sqrt(ratio)), growth)
 
 
-def _beyond_slopes(change: FrameChange, apart: int) -> NDArray[Any]:
-    """(N,) noise of every part, a variance, by `WITHOUT_SLOPES` over pixels of one colour, ``apart`` of its pitch."""
-    kernel = _of_one_colour(WITHOUT_SLOPES, apart * change.pitch)
-    beyond = cv2.filter2D(change.change, cv2.CV_64F, kernel)
-    return np.asarray(square_parts(beyond * beyond).mean(1) / 2)
+def _beyond_slopes(plane: Array, apart: int) -> NDArray[Any]:
+    """(N,) variance of every part beyond rows, columns and slopes, by `WITHOUT_SLOPES` over pixels ``apart``."""
+    beyond = cv2.filter2D(plane, cv2.CV_64F, _of_one_colour(WITHOUT_SLOPES, apart))
+    return np.asarray(square_parts(beyond * beyond).mean(1))
 
 
 def _growth(levels: Array, squares: Array) -> float:
@@ -579,9 +579,7 @@ def smoothest(plane: Array, usable: NDArray[np.bool_], pitch: int) -> float | No
     whole = square_parts(usable).all(1)
     if np.count_nonzero(whole) < _LEAST_SMOOTH:
         return None
-    beyond = cv2.filter2D(plane, cv2.CV_64F, _of_one_colour(WITHOUT_SLOPES, pitch))
-    squares = square_parts(beyond * beyond).mean(1)[whole]
-    return float(np.sqrt(np.quantile(squares, _SMOOTHEST))) / _OF_WHITE
+    return float(np.sqrt(np.quantile(_beyond_slopes(plane, pitch)[whole], _SMOOTHEST))) / _OF_WHITE
 
 
 def square_parts(plane: NDArray[Any]) -> NDArray[Any]:
@@ -759,9 +757,10 @@ def _mark(words, busy):  # type: ignore[no-untyped-def]
         busy[event_row(words[i, 1]), event_column(words[i, 1])] = 1
 
 
-def near(dark: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """(H, W): pixels with a marked one among the 3x3 around them."""
-    return np.asarray(cv2.dilate(dark.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0, np.bool_)
+def near(dark: NDArray[np.bool_], reach: int = 1) -> NDArray[np.bool_]:
+    """(H, W): pixels with a marked one no more than ``reach`` rows and columns away: among the 3x3 around them."""
+    around = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
+    return np.asarray(cv2.dilate(dark.astype(np.uint8), around) > 0, np.bool_)
 
 
 class FrameChange(NamedTuple):
@@ -811,10 +810,10 @@ def _beyond_neighbours(first: Shot, second: Shot) -> FrameChange:
     return FrameChange(level, beyond, usable, dark, first.pitch, is_own, change)
 
 
-def inner_pixels(usable: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """(H, W): those that do not lie at the border, where a neighbour counts twice."""
+def inner_pixels(usable: NDArray[np.bool_], reach: int = 1) -> NDArray[np.bool_]:
+    """(H, W): those that do not lie at the border, where a neighbour up to ``reach`` pixels away counts twice."""
     inside = np.zeros_like(usable)
-    inside[1:-1, 1:-1] = usable[1:-1, 1:-1]
+    inside[reach:-reach, reach:-reach] = usable[reach:-reach, reach:-reach]
     return inside
 
 
