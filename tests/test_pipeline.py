@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
+import threading
 import tracemalloc
 
 import numpy as np
 import pytest
 
-from kalux import Frame, Reconstructor, Recording, pipeline, reconstruct
+from kalux import Frame, Reconstructor, Recording, reconstruct
 from kalux.datasets import SensorSettings
-from kalux.errors import EventError
+from kalux.errors import EventError, FrameError
 from kalux.events import make_events
+from kalux.filters.bridged_frames import BridgedFrames
 from kalux.pipeline import execute
 from kalux.planning import plan
 from kalux.settings import altered
@@ -29,6 +31,7 @@ from builders import (
 
 every_variant = pytest.mark.parametrize("variant", VARIANTS)
 both_modes = pytest.mark.parametrize("lookahead", [True, False], ids=["lookahead", "causal"])
+every_number_of_threads = pytest.mark.parametrize("threads", [1, 4], ids="{} threads".format)
 
 
 def assert_same(images, expected):
@@ -137,31 +140,66 @@ def test_threads_change_nothing(variant, smooth, monkeypatch):
         assert counts
 
 
-def test_images_before_the_damage_come_whatever_the_threads():
+def damaged(whole: Recording, part: str) -> Recording:
+    """The same recording, whose events or frames end half-way with an error."""
+    stream, shots = np.concatenate(list(whole.events())), list(whole.frames())
+    source = whole.source
+
+    def half(items):
+        yield from items
+        raise EventError("damaged here") if part == "events" else FrameError("damaged here")
+
+    if part == "events":
+        return Recording(dataclasses.replace(source, events=lambda: half([stream[: len(stream) // 2]])))
+    return Recording(dataclasses.replace(source, frames=lambda: half(shots[: len(shots) // 2])))
+
+
+@pytest.mark.parametrize("part", ["events", "frames"])
+def test_images_before_the_damage_come_whatever_the_threads(part):
     """An error of reading comes after the images that do not need what could not be read."""
     whole = recording(6)
     made = plan(whole, rate_hz=300)
-    stream = np.concatenate(list(whole.events()))
-
-    def chunks():
-        yield stream[: len(stream) // 2]
-        raise EventError("damaged here")
-
-    broken = Recording(dataclasses.replace(whole.source, events=chunks))
-    one, two = [], []
-    for seen, threads in ((one, 1), (two, 2)):
-        with pytest.raises(EventError, match="damaged here"):
-            seen.extend(execute(broken, made, threads=threads))
-    assert 0 < len(one) < len(made.times)
-    assert_same(one, list(execute(whole, made))[: len(one)])
-    assert_same(two, one)
+    broken = damaged(whole, part)
+    seen = {threads: [] for threads in (1, 2, 4)}
+    for threads, images in seen.items():
+        with pytest.raises((EventError, FrameError), match="damaged here"):
+            images.extend(execute(broken, made, threads=threads))
+        assert_same(images, seen[1])
+    assert 0 < len(seen[1]) < len(made.times)
+    assert_same(seen[1], list(execute(whole, made))[: len(seen[1])])
+    # Who wants no more than these is not told.
+    few = dataclasses.replace(made, times=made.times[: len(seen[1])])
+    for threads in seen:
+        assert_same(execute(broken, few, threads=threads), seen[1])
     assert not own_threads()
 
 
+@pytest.mark.parametrize(
+    ("motion", "threads", "expected"),
+    [("on", 2, False), ("on", 4, True), ("off", 2, True), ("off", 1, False)],
+)
+def test_segments_are_made_ahead_where_a_core_is_free_for_it(motion, threads, expected, monkeypatch):
+    makers, segment = [], BridgedFrames.segment
+
+    def watched(*arguments):
+        makers.append(threading.current_thread().name.startswith("kalux-segments"))
+        return segment(*arguments)
+
+    rec = recording(5)
+    made = plan(rec, rate_hz=300, settings=altered(VARIANTS["default"], "filter", motion=motion))
+    monkeypatch.setattr(BridgedFrames, "segment", watched)
+    for _ in execute(rec, made, threads=threads):
+        pass
+    assert len(makers) == len(list(rec.frames()))
+    # After the last frame there is nothing to be ahead of.
+    assert sum(makers) == (len(makers) - 1 if expected else 0)
+
+
+@pytest.mark.parametrize("threads", [2, 4])
 @pytest.mark.parametrize("smooth", [False, True])
-def test_a_reconstruction_that_is_given_up_leaves_no_thread(smooth):
+def test_a_reconstruction_that_is_given_up_leaves_no_thread(smooth, threads):
     rec = recording(7)
-    images = execute(rec, plan(rec, rate_hz=300, smooth=smooth), threads=2)
+    images = execute(rec, plan(rec, rate_hz=300, smooth=smooth), threads=threads)
     next(images)
     assert own_threads()
     images.close()
@@ -237,9 +275,9 @@ class Watched(Reconstructor):
 
     most_events = most_frames = 0
 
-    def read(self, t):
+    def estimate(self, t):
         self._look()
-        return super().read(t)
+        return super().estimate(t)
 
     def push_events(self, array):
         super().push_events(array)
@@ -252,10 +290,13 @@ class Watched(Reconstructor):
 
 @pytest.fixture
 def watched(monkeypatch):
-    monkeypatch.setattr(pipeline, "Reconstructor", Watched)
+    """The pipeline's engine, which must have held something."""
+    monkeypatch.setattr("kalux.driver.Reconstructor", Watched)
     monkeypatch.setattr("kalux.recording.CHUNK_EVENTS", 250)
     Watched.most_events = Watched.most_frames = 0
-    return Watched
+    yield Watched
+    assert Watched.most_events > 0
+    assert Watched.most_frames > 0
 
 
 def long_recording(frames=200, per_frame=100, first_frame=0, last_frame=10**9):
@@ -273,10 +314,12 @@ def long_recording(frames=200, per_frame=100, first_frame=0, last_frame=10**9):
 
 
 @both_modes
-def test_memory_is_bounded(lookahead, watched):
+@every_number_of_threads
+def test_memory_is_bounded(lookahead, watched, threads):
     """A few frames' worth of 20,000 events; here and below without estimates, which the engine does not make."""
-    images = reconstruct(long_recording(), rate_hz=50, lookahead=lookahead, settings=all_given())
-    count = sum(1 for _ in images)
+    rec = long_recording()
+    made = plan(rec, rate_hz=50, lookahead=lookahead, settings=all_given())
+    count = sum(1 for _ in execute(rec, made, threads=threads))
     assert count == pytest.approx(100, abs=2)
     assert watched.most_events <= 1_000
     assert watched.most_frames <= 5
@@ -284,37 +327,45 @@ def test_memory_is_bounded(lookahead, watched):
 
 @pytest.mark.parametrize("when", ["end", "both ends"])
 @both_modes
-def test_memory_is_bounded_however_few_images_are_wanted(when, lookahead, watched):
+@every_number_of_threads
+def test_memory_is_bounded_however_few_images_are_wanted(when, lookahead, watched, threads):
     rec = long_recording()
     times = [4_000, 1_990_000] if when == "both ends" else [1_990_000]
-    images = list(reconstruct(rec, times=times, lookahead=lookahead, settings=all_given()))
+    images = list(
+        execute(rec, plan(rec, times=times, lookahead=lookahead, settings=all_given()), threads=threads)
+    )
     assert len(images) == len(times)
     assert watched.most_events <= 1_000
     assert watched.most_frames <= 5
 
 
-def test_memory_is_bounded_where_events_end_early(watched):
+@every_number_of_threads
+def test_memory_is_bounded_where_events_end_early(watched, threads):
     rec = long_recording()
     few = Recording.from_arrays(
         next(iter(rec.events())), rec.frames(), sensor_size=(4, 5), contrast_threshold=0.2
     )
-    assert list(reconstruct(few, rate_hz=50, settings=all_given()))
+    assert list(execute(few, plan(few, rate_hz=50, settings=all_given()), threads=threads))
     assert watched.most_frames <= 5
 
 
-def test_memory_is_bounded_where_frames_begin_late(watched):
+@every_number_of_threads
+def test_memory_is_bounded_where_frames_begin_late(watched, threads):
     """Events before the first exposure say nothing and need not be kept."""
     with pytest.warns(UserWarning, match="of the 20,000 events lie between"):
         rec = long_recording(first_frame=190)
-    assert list(reconstruct(rec, rate_hz=50, settings=all_given()))
+    assert list(execute(rec, plan(rec, rate_hz=50, settings=all_given()), threads=threads))
     assert watched.most_events <= 1_000
 
 
-def test_memory_is_bounded_where_frames_end_early(watched):
+@every_number_of_threads
+def test_memory_is_bounded_where_frames_end_early(watched, threads):
     with pytest.warns(UserWarning, match="of the 20,000 events lie between"):
         rec = long_recording(last_frame=10)
     times = list(range(0, 1_990_000, 10_000))
-    assert len(list(reconstruct(rec, times=times, settings=all_given()))) == len(times)
+    assert len(list(execute(rec, plan(rec, times=times, settings=all_given()), threads=threads))) == len(
+        times
+    )
     assert watched.most_events <= 1_000
 
 

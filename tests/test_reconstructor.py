@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import warnings
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from functools import lru_cache
 
 import numpy as np
@@ -107,6 +108,73 @@ def test_any_split_and_interleaving_gives_the_same_bits(variant, lookahead, sche
     for t, expected in reference(seed, variant, lookahead).items():
         if t > begin or begin == stream.frames[0].exposure_end:
             assert_same(live.read(t), expected)
+
+
+class AtOnce(Executor):
+    """Does a thing when it is submitted: a segment while the one before is in use."""
+
+    def submit(self, work, /, *arguments):
+        done = Future()
+        done.set_result(work(*arguments))
+        return done
+
+
+class WhenAsked(Executor):
+    """Does a thing when its result is asked for: a segment when the one before is gone, with its events."""
+
+    def submit(self, work, /, *arguments):
+        class Late(Future):
+            def result(self, timeout=None):
+                return work(*arguments)
+
+        return Late()
+
+
+@every_variant
+@both_modes
+@given(
+    schedule=schedules(),
+    probes=st.lists(st.integers(0, 130_000), max_size=6),
+    opener=st.sampled_from([AtOnce, WhenAsked, lambda: ThreadPoolExecutor(1)]),
+)
+@settings(max_examples=25, deadline=None)
+def test_segments_made_ahead_are_the_same(variant, lookahead, schedule, probes, opener):
+    """Whenever they are made, and whatever is pushed, read and freed meanwhile."""
+    seed, operations = schedule
+    stream = random_stream(seed)
+    expected = reference(seed, variant, lookahead)
+    waiting, probes = list(expected), iter(probes)
+    with opener() as pool:
+        live = engine(stream.sensor_size, variant, lookahead, opener=pool)
+        for kind, what in operations:
+            push(live, kind, what)
+            probe, until = next(probes, None), live.final_until
+            while waiting and until is not None and waiting[0] <= until and probe is None:
+                assert_same(live.read(waiting[0]), expected[waiting.pop(0)])
+            if probe is not None and live.begin_time is not None and live.begin_time <= probe <= waiting[0]:
+                live.read(probe)
+        live.finish()
+        for t in waiting:
+            assert_same(live.read(t), expected[t])
+
+
+def test_an_error_in_making_a_segment_ahead_is_raised_where_it_is_read():
+    stream = random_stream(2)
+    with ThreadPoolExecutor(1) as pool:
+        live = filled(stream, finished=False, opener=pool)
+        method = live._method
+        middles = [shot.middle for shot in stream.frames]
+        live.read(middles[1] - 1)
+        live._coming.result()
+        live.finish()
+
+        def fail(*_):
+            raise MemoryError("no room")
+
+        method.segment = fail
+        live.read(middles[1] + 1)  # made before; what follows is submitted now
+        with pytest.raises(MemoryError, match="no room"):
+            live.read(middles[2] + 1)
 
 
 @every_variant

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from concurrent.futures import Executor
 from typing import Final
 
 import numpy as np
@@ -23,6 +24,7 @@ def engine_of(
     *,
     threshold_is_estimate: bool,
     lookahead: bool = True,
+    opener: Executor | None = None,
 ) -> Reconstructor:
     """The engine for a recording, whose doubts have been told. See `Reconstructor` for the parameters and errors."""
     return Reconstructor(
@@ -33,6 +35,7 @@ def engine_of(
         inverse_covariance=recording.source.inverse_covariance,
         pixels=pixels,
         tells_doubts=False,
+        opener=opener,
     )
 
 

@@ -7,6 +7,7 @@ import dataclasses
 import functools
 from collections import deque
 from collections.abc import Callable, Generator, Iterator
+from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from typing import Any, Final, Literal
 
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 from kalux import memory
 from kalux.calibration.values import Calibration
 from kalux.driver import EventFeed, engine_of
+from kalux.errors import KaluxError
 from kalux.events import EventArray
 from kalux.images import Estimate, Image
 from kalux.planning import UNCERTAIN_ORIGINS, Plan, plan
@@ -133,19 +135,43 @@ def execute(
     recording = with_corrected_frames(recording, plan.mends.corrections)
     if plan.mends.layout is not None:
         recording = with_event_layout(recording, plan.mends.layout.found)
-    engine = _engine(recording, plan)
     several = threads > 1
-    if plan.smooth:
-        estimates = _smoothed_estimates(recording, engine, plan, on_events, on_backward, several)
-    else:
-        estimates = _forward_estimates(recording, engine, plan, on_events, several)
-    make = functools.partial(engine.image, with_variance=with_variance)
-    if several:
-        makers = min(threads, _MOST_MAKERS)
-        yield from made_ahead(estimates, make, _ahead(recording.sensor_size), makers, ("filter", "images"))
-    else:
-        with contextlib.closing(estimates):
-            yield from map(make, estimates)
+    with _opener(_opens_ahead(plan, threads)) as opener:
+        engine = _engine(recording, plan, opener)
+        if plan.smooth:
+            estimates = _smoothed_estimates(recording, engine, plan, on_events, on_backward, several)
+        else:
+            estimates = _forward_estimates(recording, engine, plan, on_events, several)
+        make = functools.partial(engine.image, with_variance=with_variance)
+        if several:
+            makers = min(threads, _MOST_MAKERS)
+            yield from made_ahead(
+                estimates, make, _ahead(recording.sensor_size), makers, ("filter", "images")
+            )
+        else:
+            with contextlib.closing(estimates):
+                yield from map(make, estimates)
+
+
+def _opens_ahead(plan: Plan, threads: int) -> bool:
+    """Whether segments are made in a thread of their own.
+
+    Not by two where images are made along what moves: that keeps both busy, and one more took 4 % longer.
+    """
+    return threads > (2 if plan.settings.filter.motion == "on" else 1)
+
+
+@contextlib.contextmanager
+def _opener(is_wanted: bool) -> Iterator[Executor | None]:
+    """The thread that makes the engine's segments ahead; None where it is not wanted."""
+    if not is_wanted:
+        yield None
+        return
+    pool = ThreadPoolExecutor(1, "kalux-segments")
+    try:
+        yield pool
+    finally:
+        pool.shutdown(cancel_futures=True)
 
 
 def _ahead(sensor_size: tuple[int, int]) -> int:
@@ -186,10 +212,14 @@ def _trail(plan: Plan) -> tuple[Settings, NDArray[np.bool_] | None] | None:
     return plan.settings, hot
 
 
-def _engine(recording: Recording, plan: Plan) -> Reconstructor:
-    estimated = plan.threshold_origin in UNCERTAIN_ORIGINS
+def _engine(recording: Recording, plan: Plan, opener: Executor | None = None) -> Reconstructor:
     return engine_of(
-        recording, plan.settings, plan.pixels, threshold_is_estimate=estimated, lookahead=plan.lookahead
+        recording,
+        plan.settings,
+        plan.pixels,
+        threshold_is_estimate=plan.threshold_origin in UNCERTAIN_ORIGINS,
+        lookahead=plan.lookahead,
+        opener=opener,
     )
 
 
@@ -207,24 +237,50 @@ def _forward_estimates(
     )
     with reading as chunks:
         feed = EventFeed(engine, chunks, on_events)
-        for frame in recording.frames():
-            engine.push_frame(frame)
-            feed.cover(frame.exposure_end)
-            yield from _final_estimates(engine, times)
-            if not times:
-                return
+        finals = _push_frames(recording, engine, feed)
+        with contextlib.closing(_one_later(finals) if engine.opener is not None else finals) as until:
+            for final_until in until:
+                yield from _final_estimates(engine, times, final_until)
+                if not times:
+                    return
         engine.end_frames()
         while not feed.ended and times:
             feed.push_next()
-            yield from _final_estimates(engine, times)
+            yield from _final_estimates(engine, times, engine.final_until)
         engine.finish()
-        yield from _final_estimates(engine, times)
+        yield from _final_estimates(engine, times, engine.final_until)
 
 
-def _final_estimates(engine: Reconstructor, times: deque[int]) -> Iterator[Estimate]:
-    """Estimates at the first of ``times`` as long as they are final; these are removed, and memory is freed."""
-    until = engine.final_until  # reading does not change it
+def _push_frames(
+    recording: Recording, engine: Reconstructor, feed: EventFeed
+) -> Generator[int | None, None, None]:
+    """Push all frames, each with the events up to its end; until when (us) images are final then."""
+    for frame in recording.frames():
+        engine.push_frame(frame)
+        feed.cover(frame.exposure_end)
+        yield engine.final_until
+
+
+def _one_later(items: Generator[int | None, None, None]) -> Generator[int | None, None, None]:
+    """None, and then the items, each once the next one is known, or there is none, or an error in its place.
+
+    Images of one segment are so read when the next can be made (`Reconstructor`'s opener).
+    """
+    latest = None
+    with contextlib.closing(items):
+        try:
+            for item in items:
+                yield latest
+                latest = item
+        except KaluxError:
+            yield latest
+            raise
+        yield latest
+
+
+def _final_estimates(engine: Reconstructor, times: deque[int], until: int | None) -> Iterator[Estimate]:
+    """Estimates at the first of ``times`` up to ``until``; these are removed, and memory is freed."""
     while times and until is not None and times[0] <= until:
         yield engine.estimate(times.popleft())
-    if times:
-        engine.forget(times[0])
+    if times and until is not None:
+        engine.forget(min(times[0], until))

@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import warnings
+from concurrent.futures import Executor, Future
 from typing import Any, Final, Literal
 
 import numpy as np
@@ -104,6 +105,10 @@ class Reconstructor:
         those of ``calibration``.
     tells_doubts
         Whether to warn of what can hardly be right; of a `Recording` that has been told.
+    opener
+        Makes the segment after the one that is read in the meantime, once all that it needs has been pushed: a thread
+        of its own, such as ``ThreadPoolExecutor(1)``, which the caller ends. Results are the same. None: a segment is
+        made when it is first read.
 
     Raises
     ------
@@ -133,6 +138,7 @@ class Reconstructor:
         inverse_covariance: NDArray[np.float64] | None = None,
         pixels: PixelCalibration | None = None,
         tells_doubts: bool = True,
+        opener: Executor | None = None,
     ) -> None:
         self.sensor_size = checked_size(sensor_size)
         if settings is not None:
@@ -144,7 +150,7 @@ class Reconstructor:
         if reference_exposure is not None and _whole(reference_exposure, "reference_exposure") <= 0:
             raise InputError(f"reference_exposure is {reference_exposure} us; it must be positive")
         self.settings = settings if settings is not None else named_preset(preset)
-        self.lookahead = lookahead
+        self.lookahead, self.opener = lookahead, opener
         stated = self.settings.events.with_thresholds(*checked_thresholds(contrast_threshold) or (None, None))
         self._thresholds_estimated = threshold_is_estimate or stated.threshold_on is None
         events = stated.assuming()
@@ -170,6 +176,9 @@ class Reconstructor:
         self._state: State | None = None  # at the current segment's start
         self._memory: Any = None
         self._progress: _Progress | None = None
+        self._coming: Future[tuple[Segment, Any]] | None = (
+            None  # the segment after it, and the memory after that
+        )
         self._last_frame: Frame | None = None
         self._frame_count = 0
         self._tells_doubts = tells_doubts
@@ -222,6 +231,7 @@ class Reconstructor:
         self._shots.append(shot._replace(trail=trail, bright_tail=self._bright_tail))
         self._last_frame = frame
         self._frame_count += 1
+        self._open_ahead()
 
     def measures(self, frame: Frame) -> NDArray[np.bool_]:
         """(H, W): pixels that a frame, pushed or not, measures: neither saturated nor masked."""
@@ -325,6 +335,7 @@ class Reconstructor:
         """
         t = _whole(t, "advance: the time") - self._delay
         self._complete_until = t if self._complete_until is None else max(t, self._complete_until)
+        self._open_ahead()
 
     @property
     def newest_frame_end(self) -> int | None:
@@ -678,12 +689,36 @@ class Reconstructor:
         assert self._state is not None
         complete = len(self._shots) > 1 and self._is_complete(self._shots[1])
         if self._progress is None or (complete and not self._progress.ready):
-            segment, memory = self._method.segment(
-                self._memory, self._shots[0], self._shots[1] if complete else None, self._events.chunks
-            )
+            coming, self._coming = self._coming, None
+            if coming is not None:
+                segment, memory = coming.result()
+            else:
+                following = self._shots[1] if complete else None
+                segment, memory = self._method.segment(
+                    self._memory, self._shots[0], following, self._events.chunks
+                )
             cursor = self._method.begin(segment, self._state)
             self._progress = _Progress(segment, memory, cursor, ready=complete, starts_frame=True)
+            self._open_ahead()
         return self._progress
+
+    def _open_ahead(self) -> None:
+        """Have the segment after the current one made by the opener, if all that it needs is here.
+
+        It follows from frames, events and the memory before, not from the filter's state.
+        """
+        progress = self._progress
+        if self.opener is None or self._coming is not None or progress is None or not progress.ready:
+            return
+        follows = int(progress.starts_frame)  # the lead-in is followed by the segment of its own frame
+        if len(self._shots) < follows + 2:
+            return
+        shot, following = self._shots[follows : follows + 2]
+        if not self._is_complete(following):
+            return
+        first = self._events.number(progress.segment.end)  # those before will have been dropped
+        events = list(self._events.after(first, self._method.needed_until(following)))
+        self._coming = self.opener.submit(self._method.segment, progress.memory, shot, following, events)
 
     def _commit(self, progress: _Progress) -> None:
         """Move the state to the end of a final segment; forget its frame and events."""
