@@ -92,3 +92,26 @@ def test_noise_is_stored_as_it_is():
 def test_the_same_image_is_the_same_file():
     values = np.random.default_rng(0).normal(size=(33, 20)).astype(np.float32)
     assert exr_file({"Y": values}, {"t_us": "1"}) == exr_file({"Y": values.copy()}, {"t_us": "1"})
+
+
+def header_length(data: bytes) -> int:
+    """Magic and version, then attributes: name, type, size, value; an empty name ends them."""
+    at = 8
+    while data[at] != 0:
+        at = data.index(b"\0", data.index(b"\0", at) + 1) + 1
+        at += 4 + struct.unpack_from("<i", data, at)[0]
+    return at + 1
+
+
+@pytest.mark.parametrize("height", [1, 16, 17, 50])
+def test_the_table_says_where_each_block_begins(height):
+    """OpenEXR's own library finds blocks without it, other readers do not."""
+    values = np.random.default_rng(0).normal(size=(height, 30)).round().astype(np.float32)
+    data = exr_file({"Y": values, "variance": values}, {"t_us": "5"})
+    count = -(-height // 16)
+    offsets = struct.unpack_from(f"<{count}Q", data, header_length(data))
+    ends = [*offsets[1:], len(data)]
+    assert offsets[0] == header_length(data) + 8 * count
+    for index, (start, end) in enumerate(zip(offsets, ends, strict=True)):
+        line, size = struct.unpack_from("<2i", data, start)
+        assert (line, start + 8 + size) == (16 * index, end)
