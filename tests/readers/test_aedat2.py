@@ -154,6 +154,23 @@ def test_the_header_says_how_the_shutter_works(path, name, stated, rolling, said
     assert bool(source.missing) == (said is not None)
 
 
+@pytest.mark.parametrize("rolling", [False, True])
+def test_preferences_of_older_versions_count_where_there_are_no_newer_ones(path, rolling):
+    """jAER keeps what it once wrote under another name."""
+    older = f'                <entry key="DAVIS240C.GlobalShutter" value="{str(not rolling).lower()}"/>'
+    newer = older.replace("GlobalShutter", "APS.GlobalShutter")
+    opposite = older.replace(str(not rolling).lower(), str(rolling).lower())
+    frames = frames_of(2)
+    reads = [samples(frame, rolling=rolling) for frame in frames]
+    for lines in ((older,), (newer, opposite), (opposite, newer)):
+        source = write(path, *reads, head=header(CHIP, *lines))
+        assert same_frames(source.frames(), frames)
+        assert any("rolling shutter;" in sentence for sentence in source.missing) == rolling
+    # Of the same age, and not agreed: it is not known.
+    source = write(path, *reads, head=header(CHIP, older, opposite.replace("Global", "global")))
+    assert any("does not say" in sentence for sentence in source.missing)
+
+
 def test_reads_that_are_interleaved_are_of_a_rolling_shutter(path):
     frames = frames_of(2, exposure=100)  # shorter than the readout
     source = write(path, *(samples(frame, rolling=True) for frame in frames))

@@ -86,6 +86,13 @@ def test_a_file_cut_short(path):
         all_events(readers.read(path))
 
 
+@pytest.mark.parametrize("size", [(0, 40), (30, 0), (0, 0)])
+def test_a_sensor_without_pixels_is_damage(path, size):
+    path.write_bytes(encoded(small_events()[:0], size))
+    with pytest.raises(FormatError, match=f"has {size[1]}x{size[0]} pixels; its header is damaged"):
+        readers.read(path)
+
+
 def test_an_event_outside_the_sensor_is_located(path):
     path.write_bytes(encoded(small_events(), SIZE) + b"\x00\x28\x00\x00\x00")
     with pytest.raises(FormatError, match=r"outside the sensor of 40x30 pixels \(byte \d+\)"):
