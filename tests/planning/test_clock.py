@@ -110,3 +110,17 @@ def test_faulty_frames_are_mended_in_the_clock_of_the_events(seen, expected):
     assert mends.faults.copies
     assert (mends.layout.found, found.coarse.sure) == (AS_STORED, True)
     assert found.offset == pytest.approx(expected + 70_000, abs=100)
+
+
+@pytest.mark.parametrize(("sure", "asked"), [(True, 0), (False, 1)])
+def test_layouts_are_tried_where_the_offset_is_not_sure(seen, sure, asked, monkeypatch):
+    """They cost eight correlations, which an offset that is sure does not need."""
+    found = offset_of_recording(seen, SETTINGS, reach=200_000)[0]
+    coarse = found.coarse._replace(ratio=np.inf if sure else 1.0)
+    assert coarse.sure == sure
+    tried = []
+    monkeypatch.setattr(clock, "estimate_offset", lambda *_, **__: found._replace(coarse=coarse))
+    monkeypatch.setattr(clock, "_other_layout", lambda *arguments: tried.append(arguments))
+    _, mends = offset_of_recording(seen, SETTINGS, reach=200_000)
+    assert len(tried) == asked
+    assert mends.layout.found == AS_STORED
