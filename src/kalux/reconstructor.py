@@ -176,9 +176,8 @@ class Reconstructor:
         self._state: State | None = None  # at the current segment's start
         self._memory: Any = None
         self._progress: _Progress | None = None
-        self._coming: Future[tuple[Segment, Any]] | None = (
-            None  # the segment after it, and the memory after that
-        )
+        # The segment after it, which is being made, and the memory after that.
+        self._coming: Future[tuple[Segment, Any]] | None = None
         self._last_frame: Frame | None = None
         self._frame_count = 0
         self._tells_doubts = tells_doubts
