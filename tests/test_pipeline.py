@@ -140,18 +140,19 @@ def test_threads_change_nothing(variant, smooth, monkeypatch):
         assert counts
 
 
-def damaged(whole: Recording, part: str) -> Recording:
+def broken_off(whole: Recording, part: str) -> Recording:
     """The same recording, whose events or frames end half-way with an error."""
     stream, shots = np.concatenate(list(whole.events())), list(whole.frames())
-    source = whole.source
+    left, error = {
+        "events": ([stream[: len(stream) // 2]], EventError),
+        "frames": (shots[: len(shots) // 2], FrameError),
+    }[part]
 
-    def half(items):
-        yield from items
-        raise EventError("damaged here") if part == "events" else FrameError("damaged here")
+    def read():
+        yield from left
+        raise error("damaged here")
 
-    if part == "events":
-        return Recording(dataclasses.replace(source, events=lambda: half([stream[: len(stream) // 2]])))
-    return Recording(dataclasses.replace(source, frames=lambda: half(shots[: len(shots) // 2])))
+    return Recording(dataclasses.replace(whole.source, **{part: read}))
 
 
 @pytest.mark.parametrize("part", ["events", "frames"])
@@ -159,7 +160,7 @@ def test_images_before_the_damage_come_whatever_the_threads(part):
     """An error of reading comes after the images that do not need what could not be read."""
     whole = recording(6)
     made = plan(whole, rate_hz=300)
-    broken = damaged(whole, part)
+    broken = broken_off(whole, part)
     seen = {threads: [] for threads in (1, 2, 4)}
     for threads, images in seen.items():
         with pytest.raises((EventError, FrameError), match="damaged here"):

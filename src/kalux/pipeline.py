@@ -141,7 +141,7 @@ def execute(
     if plan.mends.layout is not None:
         recording = with_event_layout(recording, plan.mends.layout.found)
     several = threads > 1
-    with _opener(threads) as opener:
+    with _opener(threads) as opener:  # ends after the thread that filters, which gives it work
         engine = _engine(recording, plan, opener)
         if plan.smooth:
             estimates = _smoothed_estimates(recording, engine, plan, on_events, on_backward, several)
@@ -158,17 +158,9 @@ def execute(
                 yield from map(make, estimates)
 
 
-@contextlib.contextmanager
-def _opener(threads: int) -> Iterator[Executor | None]:
+def _opener(threads: int) -> AbstractContextManager[Executor | None]:
     """The thread that makes the engine's segments ahead; None with ``threads`` for which there is no core left."""
-    if threads <= _BUSY:
-        yield None
-        return
-    pool = ThreadPoolExecutor(1, "kalux-segments")
-    try:
-        yield pool
-    finally:
-        pool.shutdown(cancel_futures=True)
+    return ThreadPoolExecutor(1, "kalux-segments") if threads > _BUSY else contextlib.nullcontext()
 
 
 def _ahead(sensor_size: tuple[int, int]) -> int:
@@ -277,7 +269,10 @@ def _one_later(items: Generator[int | None, None, None]) -> Generator[int | None
 
 def _final_estimates(engine: Reconstructor, times: deque[int], until: int | None) -> Iterator[Estimate]:
     """Estimates at the first of ``times`` up to ``until``; these are removed, and memory is freed."""
-    while times and until is not None and times[0] <= until:
+    if until is None:
+        return
+    while times and times[0] <= until:
         yield engine.estimate(times.popleft())
-    if times and until is not None:
+    if times:
+        # Beyond, the engine would wait for the segment that is made ahead.
         engine.forget(min(times[0], until))

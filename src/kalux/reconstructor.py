@@ -686,13 +686,13 @@ class Reconstructor:
     def _open(self) -> _Progress:
         """The current segment; made anew when what was pushed meanwhile completes it."""
         assert self._state is not None
-        complete = len(self._shots) > 1 and self._is_complete(self._shots[1])
+        following = self._complete_frame(1)
+        complete = following is not None
         if self._progress is None or (complete and not self._progress.ready):
             coming, self._coming = self._coming, None
             if coming is not None:
                 segment, memory = coming.result()
             else:
-                following = self._shots[1] if complete else None
                 segment, memory = self._method.segment(
                     self._memory, self._shots[0], following, self._events.chunks
                 )
@@ -709,15 +709,21 @@ class Reconstructor:
         progress = self._progress
         if self.opener is None or self._coming is not None or progress is None or not progress.ready:
             return
-        follows = int(progress.starts_frame)  # the lead-in is followed by the segment of its own frame
-        if len(self._shots) < follows + 2:
-            return
-        shot, following = self._shots[follows : follows + 2]
-        if not self._is_complete(following):
+        index = int(progress.starts_frame)  # the lead-in is followed by the segment of its own frame
+        following = self._complete_frame(index + 1)
+        if following is None:
             return
         first = self._events.number(progress.segment.end)  # those before will have been dropped
         events = list(self._events.after(first, self._method.needed_until(following)))
-        self._coming = self.opener.submit(self._method.segment, progress.memory, shot, following, events)
+        self._coming = self.opener.submit(
+            self._method.segment, progress.memory, self._shots[index], following, events
+        )
+
+    def _complete_frame(self, index: int) -> Shot | None:
+        """The frame ``index`` after that of the current segment, once all events that its boundary needs are here."""
+        if index >= len(self._shots) or not self._is_complete(self._shots[index]):
+            return None
+        return self._shots[index]
 
     def _commit(self, progress: _Progress) -> None:
         """Move the state to the end of a final segment; forget its frame and events."""
